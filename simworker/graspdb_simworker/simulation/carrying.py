@@ -359,6 +359,18 @@ def _displacement(move, centre, jaw):  # type: ignore[no-untyped-def]
     return math.sqrt(total) + turn + abs(move[6])
 
 
+@njit(cache=True)
+def _areas(body, jaw, centre, turn, fingers, spacing, areas):  # type: ignore[no-untyped-def]
+    """Write the areas that touch or soon may; returns how many. Where there is no room for so many, they are
+    larger."""
+    axes = _matrix(turn)
+    count, _ = find_areas(body, jaw, centre, axes, fingers, REACH_M, spacing, areas)
+    while count >= areas.shape[0]:
+        spacing *= 2.0
+        count, _ = find_areas(body, jaw, centre, axes, fingers, REACH_M, spacing, areas)
+    return count
+
+
 # long: settling and carrying are one loop, so that both treat a step alike
 @njit(cache=True)
 def carry(body, jaw, grip, mass_kg, moments, centre, turn, fingers, frames, dt, spacing, lost, path):  # type: ignore[no-untyped-def]
@@ -372,12 +384,12 @@ def carry(body, jaw, grip, mass_kg, moments, centre, turn, fingers, frames, dt, 
     the farthest it turned, radians, and how many steps were made.
     """
     areas, spare = np.zeros((AREAS, COLUMNS)), np.zeros((AREAS, COLUMNS))
-    count, deepest = find_areas(body, jaw, centre, _matrix(turn), fingers, _START_REACH_M, spacing, areas)
+    _, deepest = find_areas(body, jaw, centre, _matrix(turn), fingers, _START_REACH_M, 0.0, areas)
     for finger in range(2):
         # The engine's hulls have a margin, and what rang when it stopped may be off either finger.
         if deepest[finger] > -_START_REACH_M:
             fingers[finger] += deepest[finger]
-    count, _ = find_areas(body, jaw, centre, _matrix(turn), fingers, REACH_M, spacing, areas)
+    count = _areas(body, jaw, centre, turn, fingers, spacing, areas)
     inertia, push, move, speed = np.zeros((_FREE, _FREE)), np.zeros(_FREE), np.zeros(_FREE), np.zeros(_FREE)
     factors, pivots, known = np.zeros((_FREE, _FREE)), np.zeros(_FREE, dtype=np.int64), False
     for k in range(3):
@@ -430,7 +442,7 @@ def carry(body, jaw, grip, mass_kg, moments, centre, turn, fingers, frames, dt, 
         if moved > FOUND_ANEW_M:
             areas, spare = spare, areas
             before = count
-            count, _ = find_areas(body, jaw, centre, _matrix(turn), fingers, REACH_M, spacing, areas)
+            count = _areas(body, jaw, centre, turn, fingers, spacing, areas)
             _keep_shear(spare, before, areas, count, spacing)
             since[:] = 0.0
             known = False

@@ -37,7 +37,7 @@ from graspdb_simworker.simulation.bodies import (
 )
 from graspdb_simworker.simulation.engines import installed
 from graspdb_simworker.simulation.engines.world import Stepping
-from graspdb_simworker.simulation.force_test import rating
+from graspdb_simworker.simulation.force_test import GRAVITY_M_S2, rating
 from graspdb_simworker.simulation.labels import RATED
 
 APPROACH_GAP_M = 0.0005
@@ -51,6 +51,10 @@ NO_DOUBT = (4.0, 1.8, 1.6, 1.5, 1.4, 1.2, 1.2, 1.2)
 heavy object often still creeps into a better hold, what moves between the fingers makes the forces ring, and
 a low reading may be an instant at which the fingers hardly touch. The median of the last
 :data:`graspdb_simworker.simulation.labels.RATED` counts, the very first reading only if it is the last."""
+EARLY_AGE_S, AT_ONCE = 1.0 / 60.0, 16.0
+"""What already holds so many times the weight at this age of the stall is read no more, nor is a first
+reading that does doubted for the fingers' depth: such a hold is not lost again. Looked for only where
+friction could hold as much, and not at the finest step."""
 SETTLED = 1.02
 """Two readings in a row that differ by less than this factor, and hold what the last one must, are the last,
 too: the forces have settled."""
@@ -180,6 +184,8 @@ class GraspWorld:
         self._carrier = motion and carrying.Carrier(
             parts, mass, gripper, friction, motion, self._carrying.dt_s, self._carrying.area_m, compliance
         )
+        # Times its weight, by both fingers.
+        self._may_hold = 2.0 * friction * gripper.closing_force_n / (mass.mass_kg * GRAVITY_M_S2)
         self._to_body = inverse(mass.principal_xyzw)
         self._radius = mass.radius_of(parts)
         # Where the object was when it was last looked for between the fingers, and how deep.
@@ -281,6 +287,8 @@ class GraspWorld:
         carried = self._carrier is not None
         ages = (MOVED_AFTER_S,) if carried else READING_AGES_S
         deepest = CARRIED_SUNK_M if carried else STALLED_SUNK_M
+        # When the stall began at whose early age was looked.
+        seen_early = -1.0 if finer and not carried and self._may_hold >= AT_ONCE else math.inf
         while elapsed < limit:
             opening = advance(look)
             steps += look
@@ -312,7 +320,7 @@ class GraspWorld:
                 if not carried:
                     ratings.append(rating(contacts[-1], gripper, self.mass.mass_kg, self.friction))
                 if len(contacts) == len(ages) or (
-                    depth <= (deepest if len(contacts) > 1 else CARRIED_SUNK_M)
+                    depth <= (deepest if len(contacts) > 1 or ratings[-1] >= AT_ONCE else CARRIED_SUNK_M)
                     and (ratings[-1] >= NO_DOUBT[len(contacts) - 1] or settled(ratings))
                 ):
                     if not finer or not contradictory(ratings):
@@ -327,6 +335,12 @@ class GraspWorld:
                     mark_opening, mark_time = opening, elapsed
                     contacts.clear()
                     ratings.clear()
+            elif seen_early < mark_time <= elapsed - EARLY_AGE_S + 1e-9 and squeezing and depth <= deepest:
+                seen_early, early = mark_time, engine.contacts()
+                held = rating(early, gripper, self.mass.mass_kg, self.friction)
+                if held >= AT_ONCE:
+                    contacts, ratings, end = [early], [held], End.STALLED
+                    break
             looks += 1
             # What both fingers press is between them.
             if looks % _EMPTY_CHECK_LOOKS == 0 and not squeezing and not self._between():

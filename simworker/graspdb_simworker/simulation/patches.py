@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from graspdb_simworker.simulation.bodies import Gripper, MassProperties, Part
 
-AREAS = 4096
-"""Room for so many areas; what would be more is left out."""
+AREAS = 8192
+"""Room for so many areas: what would be more is divided less finely."""
 BODY, LEVER, NORMAL, AREA, DEPTH, SHEAR, OPENS, KEY, COLUMNS = 0, 3, 6, 9, 10, 11, 14, 15, 16
 """Columns of an area: its place on the object in the principal frame and from the centre of mass in the
 jaw's axes (metres), the patch's normal into the object, size (m^2) and depth (m); shear (m); by how much the
@@ -32,6 +32,8 @@ SHALLOW_M = 0.001
 """A part that reaches less into a finger than this, from the inner side, touches that side."""
 _SLOPE_M = 1e-4
 """An area's depth varies by no more than this, or it is divided further."""
+_SOON_M = 1.5e-4
+"""What is farther from a face is not divided: it does not come to touch it before patches are found again."""
 _LEAST_COSINE = 0.2
 
 
@@ -112,23 +114,24 @@ def _clip(polygon, count, axis, sign, limit, cut):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _divide(stack, axis, spacing, size, areas, count):  # type: ignore[no-untyped-def]
+def _divide(stack, axis, sign, offset, spacing, size, areas, count):  # type: ignore[no-untyped-def]
     """Cut the triangle at the stack's bottom until its pieces are small, and write their centroids and sizes
-    (times ``size``) as areas; returns the number of areas then."""
-    steep = spacing / _SLOPE_M
+    (times ``size``) as areas; returns the number of areas then. The face is as in :func:`_face`."""
     top = 1
     while top > 0:
         top -= 1
-        longest, edge = 0.0, 0
+        longest, edge, nearest = 0.0, 0, -np.inf
         for i in range(3):
             j = (i + 1) % 3
             length = 0.0
             for k in range(3):
-                d = stack[top, j, k] - stack[top, i, k]
-                length += d * d * (steep * steep if k == axis else 1.0)
+                length += (stack[top, j, k] - stack[top, i, k]) ** 2
+            rise = abs(stack[top, j, axis] - stack[top, i, axis])
+            length = max(math.sqrt(length) / spacing, rise / _SLOPE_M)
             if length > longest:
                 longest, edge = length, i
-        if longest <= spacing * spacing or top + 2 > stack.shape[0]:
+            nearest = max(nearest, sign * (offset - stack[top, i, axis]))
+        if longest <= 1.0 or nearest < -_SOON_M or top + 2 > stack.shape[0]:
             if count >= areas.shape[0]:
                 return count
             ax, ay, az = stack[top, 0]
@@ -207,7 +210,7 @@ def _face(points, triangles, axis, sign, offset, low, high, reach, spacing, area
             for k in range(3):
                 push[k] -= 0.5 * math.sqrt(size) * (middle + reach) * normal[k] / length
             if facing > 1e-3:
-                count = _divide(stack, axis, spacing, facing, areas, count)
+                count = _divide(stack, axis, sign, offset, spacing, facing, areas, count)
     if count > began:
         length = math.sqrt(push[0] ** 2 + push[1] ** 2 + push[2] ** 2)
         cosine = sign * push[axis] / length if length > 0.0 else 0.0
@@ -245,7 +248,8 @@ def _touched_face(points, triangles, low, high, side, reach):  # type: ignore[no
 # long: boxes by parts, with what is told apart for each
 @njit(cache=True)
 def find_areas(body, jaw, centre, axes, fingers, reach, spacing, areas):  # type: ignore[no-untyped-def]
-    """Write the areas (n, COLUMNS) in which an object touches a jaw or comes nearer than ``reach``.
+    """Write the areas (n, COLUMNS) in which an object touches a jaw or comes nearer than ``reach``; none if
+    ``spacing`` is 0.
 
     The object's ``centre`` of mass and principal ``axes`` (3, 3), columns, are in the tool frame; ``fingers``
     (2,) how far the inner faces are from y = 0: the first at -y. Returns n, and (2,) how deep the object is
