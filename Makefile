@@ -8,6 +8,8 @@ PACKAGES := graspdb_density graspdb_geometry graspdb_estimators graspdb_robots g
 JOBS ?= 2
 KEEP ?=
 VIEW ?=
+# Where Python keeps nothing compiled, every process of the tests compiles everything anew, assertions too.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: help install docs demo test chromium test-core test-long test-compose check format bench load openapi requirements recompile clean

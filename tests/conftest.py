@@ -52,6 +52,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
     # A developer's own service, key and settings are no part of any test.
     for name in [name for name in os.environ if name.startswith("GRASPDB_") and "_TEST_" not in name]:
         del os.environ[name]
+    # The processes that tests start keep what they compile, as a user's do.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     # The same question has the same answer while nothing is posted; what is learned has tests of its own.
     os.environ["GRASPDB_LEARNED_ESTIMATES"] = "false"
     one_tls_context()
@@ -72,10 +74,12 @@ def eventually() -> Callable[..., Any]:
     """``eventually(condition, seconds=60)`` waits until a condition holds; what it came to."""
 
     def wait(condition: Callable[[], Any], seconds: float = 60.0) -> Any:
-        deadline = time.monotonic() + seconds
+        deadline, pause = time.monotonic() + seconds, 0.02
         while not (found := condition()):
             assert time.monotonic() < deadline, "it never happened"
-            time.sleep(0.02)
+            time.sleep(pause)
+            # What takes long is asked after less often: to ask may cost more than what is waited for.
+            pause = min(1.3 * pause, 0.3)
         return found
 
     return wait

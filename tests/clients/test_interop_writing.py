@@ -76,7 +76,7 @@ def _written(folder: Path, grasps: FileGrasps, format: str, gripper: GripperProf
     return interop.read(path, gripper=gripper, **SAID.get(format, {}))
 
 
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(
     seed=st.integers(0, 2**31),
     outcomes=st.lists(st.sampled_from(["success", "failure"]), min_size=1, max_size=6),
@@ -124,7 +124,7 @@ def test_tables_keep_all(
 POSTURES = ("isaac", "moveit", "rosbag", "csv", "jsonl")
 
 
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=2, deadline=None)
 @given(postures=st.lists(st.lists(st.floats(0.001, 0.04), min_size=4, max_size=4), min_size=1, max_size=4))
 @pytest.mark.parametrize(("first", "second"), list(itertools.product(POSTURES, POSTURES)))
 def test_postures_go_through_every_pair_that_has_them(

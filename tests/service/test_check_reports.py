@@ -21,6 +21,9 @@ from graspdb_density import se3
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.tables import report_runs
 
+#: Seconds of sums over draws, which the other tests read from both databases.
+ONCE = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+
 Poses = tuple[NDArray[np.float64], NDArray[np.float64]]
 Post = Callable[..., dict[str, Any]]
 Make = Callable[..., str]
@@ -201,6 +204,7 @@ def test_calibration_judges_grasps_that_were_simulated_again(filled: httpx.Clien
     assert png.content.startswith(b"\x89PNG")
 
 
+@ONCE
 def test_convergence_matched_by_the_success_of_simulated_draws(filled: httpx.Client) -> None:
     http = filled
     kernel = http.post("/kernels", json={"object": "thing"}).json()

@@ -36,6 +36,8 @@ WAYS_OUT = (
 )  # fmt: skip
 #: From 200 successes on there are curves and widths.
 COUNT = 320
+#: Much as others are to the reports; densities and mixtures meet all of them.
+LIKE_OTHERS = {"one rotation", "one position", "two poses", "huge", "half turns", "antipodal twins"}
 
 
 def answered(http: httpx.Client, path: str, *, drawn: bool = True) -> dict[str, Any] | None:
@@ -57,7 +59,9 @@ def answered(http: httpx.Client, path: str, *, drawn: bool = True) -> dict[str, 
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.long] if kind in LIKE_OTHERS else []) for kind in KINDS]
+)
 def test_a_report_or_a_refusal(sqlite_http: httpx.Client, make_object: Make, post: Post, kind: str) -> None:
     http = sqlite_http
     trials = KINDS[kind](COUNT, np.random.default_rng(0))

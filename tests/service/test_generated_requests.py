@@ -230,8 +230,8 @@ def short(
 
 @pytest.mark.parametrize("operation", OPERATIONS)
 def test_some_requests(short: tuple[httpx.Client, Ids], operation: str) -> None:
-    _ask(short[0], operation, short[1], GenerationMode.POSITIVE, 16)
-    _ask(short[0], operation, short[1], GenerationMode.NEGATIVE, 6)
+    _ask(short[0], operation, short[1], GenerationMode.POSITIVE, 10)
+    _ask(short[0], operation, short[1], GenerationMode.NEGATIVE, 4)
 
 
 @pytest.mark.long

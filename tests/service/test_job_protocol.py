@@ -44,7 +44,7 @@ DENTED = [*DUMBBELL, (_SLIT[0], _SLIT[1][:, ::-1])]
 
 @pytest.mark.parametrize(
     ("examples", "steps"),
-    [(10, 30), pytest.param(150, 50, marks=[pytest.mark.long, pytest.mark.timeout(3600)])],
+    [(6, 30), pytest.param(150, 50, marks=[pytest.mark.long, pytest.mark.timeout(3600)])],
 )
 def test_the_job_protocol_against_a_model(database_url: str, serve: Serve, examples: int, steps: int) -> None:
     database = Database(database_url, pool_size=2)

@@ -18,6 +18,9 @@ from graspdb_geometry.features.jaw_pairs import pairs_of_mesh
 from graspdb_geometry.features.ridges import ridges_of_mesh
 from graspdb_geometry.poses import ToolPoses
 
+#: A fit does not depend on the database; what is refused and kept is tested on both.
+ONCE = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+
 Floats = NDArray[np.float64]
 Pair = tuple[Floats, Floats]
 Post = Callable[..., dict[str, Any]]
@@ -87,6 +90,7 @@ def expected(kernel: dict[str, Any], poses: Pair, size: tuple[float, float, floa
     return np.exp(density.log_density(se3.Poses.of(*at)))
 
 
+@ONCE
 @pytest.mark.parametrize("alignment", ["edge", "surface-pair"])
 def test_fitted_along_its_edges_and_used_on_another(
     http: httpx.Client, make_object: Make, post: Post, put_box: PutBox, alignment: str
@@ -179,6 +183,7 @@ def field(count: int, seed: int) -> tuple[Pair, NDArray[np.bool_]]:
     return (p, q), rng.random(count) < chance
 
 
+@ONCE
 def test_a_kernel_that_predicts_success_is_used_for_that_alone(
     http: httpx.Client, make_object: Make, post: Post
 ) -> None:
@@ -240,6 +245,7 @@ def test_a_kernel_that_predicts_success_is_used_for_that_alone(
     assert problem(http.get("/objects/thing/density?kernel=anisotropic"), 409)
 
 
+@ONCE
 def test_success_predicted_along_the_object_s_own_axes(
     http: httpx.Client, make_object: Make, post: Post, put_box: PutBox
 ) -> None:

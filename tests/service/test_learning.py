@@ -17,6 +17,9 @@ from graspdb_density import se3
 from graspdb_service.storage.database import Database
 from graspdb_service.storage.tables import learned_estimators
 
+#: What is learned does not depend on the database; how it is kept does, and is tested on both.
+ONCE = pytest.mark.parametrize("database_url", ["sqlite"], indirect=True)
+
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Poses = tuple[Floats, Floats]
@@ -81,6 +84,7 @@ def bar(database_url: str, serve: Serve, put_box: PutBox) -> Iterator[httpx.Clie
         yield http
 
 
+@ONCE
 def test_from_enough_attempts_it_is_learned_and_better(
     bar: httpx.Client, database_url: str, serve: Serve, post: Post, eventually: Eventually
 ) -> None:
@@ -136,6 +140,7 @@ def test_it_is_kept_up(bar: httpx.Client, post: Post, eventually: Eventually) ->
     eventually(lambda: ask(bar, asked)["estimator"]["attempts"] == 640, seconds=120)
 
 
+@ONCE
 def test_without_a_shape_the_kernel_estimate_is_set_right_or_left(
     database_url: str, serve: Serve, post: Post, eventually: Eventually
 ) -> None:
