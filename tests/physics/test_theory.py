@@ -52,6 +52,12 @@ def test_labels_flip_at_the_limit(case: Case, friction: float, protocol: str) ->
     judge(bench.row(case.rubbing(friction), protocol, "standard", CORNERS))
 
 
+def test_a_round_grip_of_many_small_areas_holds_at_the_fine_step() -> None:
+    """The thinnest of the cylinders, whose strips of contact are cut the finest, and the plainest."""
+    case = closed_forms.cylinder_by_its_side(0.008, 0.07, "z").rubbing(0.4)
+    judge(bench.row(case, "lift", "fine", (0.8, 1.25)))
+
+
 @pytest.mark.parametrize(
     ("case", "friction"),
     [
