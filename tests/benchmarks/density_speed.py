@@ -33,11 +33,13 @@ from sklearn.neighbors import KernelDensity
 
 from graspdb_density import (
     AnisotropicKernel,
+    DiagonalKernel,
     GraspDensity,
     IsotropicKernel,
     MixtureDensity,
     Region,
     SampledKernel,
+    SuccessModel,
     se3,
 )
 from graspdb_density._compiled import exp, isotropic
@@ -305,6 +307,25 @@ def anisotropic(rng: np.random.Generator) -> None:
     replaced(rng)
 
 
+def chances(rng: np.random.Generator) -> None:
+    """Success probabilities of attempts, under one width of each kind and under widths for every axis."""
+    print("\nsuccess probability with its nearest attempt, microseconds a pose on one core")
+    print("attempts  one width of each kind   a width an axis   ratio")
+    wide = DiagonalKernel((0.009, 0.015, 0.006, *np.radians([20.0, 20.0, 14.0])))
+    for count in (2_000, 160_000):
+        rows, held = shell(count, rng), rng.random(count) < 0.3
+        attempts = se3.Poses.of(*rows)
+        poses = se3.Poses.of(*queries(rows, 2_000, IsotropicKernel(0.004, math.radians(4.0)), rng))
+        kernels = IsotropicKernel(0.015, math.radians(20.0)), wide
+        models = [SuccessModel.build(attempts, held, kernel=kernel) for kernel in kernels]
+        one, six = interleaved(
+            ROUNDS,
+            lambda m=models[0], q=poses: m.evaluate_near(q),
+            lambda m=models[1], q=poses: m.evaluate_near(q),
+        )
+        print(f"{count:8}  {500 * one:22.1f}   {500 * six:15.1f}   {six / one:5.1f}")
+
+
 def replaced(rng: np.random.Generator) -> None:
     """A mixture of 2 fitted to the 900 displacements of a sampled kernel, beside that kernel."""
     # Half of all neighbours are close by; half are spread along the jaw's y and turned about it.
@@ -411,6 +432,7 @@ def main(plot: str | None = None) -> None:
     brute_force(rng)
     maxima(rng)
     anisotropic(rng)
+    chances(rng)
     growth(rng, plot)
 
 
