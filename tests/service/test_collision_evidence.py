@@ -53,7 +53,7 @@ def test_what_held_is_not_impossible(sqlite_http: httpx.Client, block: str) -> N
     assert found["success_probability"][0] > 0.7
     assert any("in 54 of 54 grasps that held" in text for text in found["warnings"])
     density = sqlite_http.get(f"{block}/density").json()
-    assert any("decides no success probability" in text for text in density["warnings"])
+    assert any("decide no success probability" in text for text in density["warnings"])
     best = sqlite_http.get(f"{block}/best-grasp", params={"collision_free": "false"}).json()
     assert best["grasps"][0]["success_probability"] > 0.7
     assert best["warnings"] == found["warnings"]
@@ -93,9 +93,7 @@ def test_the_best_by_success_probability_closes_on_something(sqlite_http: httpx.
     assert as_asked["status"] == "ok"
 
 
-def test_real_grasps_that_closed_on_nothing_say_that_geometry_is_off(
-    sqlite_http: httpx.Client, block: str
-) -> None:
+def test_the_mesh_may_lack_what_real_grasps_held(sqlite_http: httpx.Client, block: str) -> None:
     rng = np.random.default_rng(0)
     outcomes = ["success"] * 54 + ["slipped"] * 6
     above = _trials(rng.normal(0.08, 0.002, 60), outcomes, "robot")
@@ -103,6 +101,5 @@ def test_real_grasps_that_closed_on_nothing_say_that_geometry_is_off(
     found = _ask(sqlite_http, block, 0.08)
     assert found["collision_free"] == [True]
     assert found["success_probability"][0] > 0.7
-    assert any("nothing between its fingers" in text for text in found["warnings"])
-    asked = {"objective": "success_probability"}
+    asked = {"objective": "success_probability", "half_spaces": [[0.0, 0.0, 1.0, 0.07]]}
     assert sqlite_http.post(f"{block}/best-grasp", json=asked).json()["status"] == "ok"

@@ -88,7 +88,7 @@ def test_trials_keep_their_version_and_queries_mix_all_with_a_warning(
 ) -> None:
     http.post("/grippers", json={"id": "mine", **MINE})
     thing = make_object(http)
-    put_box(http, thing, (0.04, 0.03, 0.2))
+    put_box(http, thing)
     for _ in range(2):
         _post(http, thing, "mine")
     _post(http, thing, None)

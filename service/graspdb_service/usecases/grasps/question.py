@@ -127,6 +127,12 @@ def question_of(
             return objectives.by_success(wide, chance, believed, near.pull, threads)
         return objectives.by_density(search, threads)
 
+    closes = test if built.search is None else None
+    if by_success and model is not None and request.collision_free is not False:
+        # Between grasps that held lie others that hold nothing, as they do between those on a prior's pairs.
+        closes = ctx.evidence.closing(built)
+        closes = None if closes is None else closes.preshaped(request.pre_opening_m)
+
     def complete() -> Question:
         by, ranking = ranked()
         by = by.with_breath()
@@ -135,10 +141,6 @@ def question_of(
             separated = request.min_separation_m is not None or request.min_separation_deg is not None
             engine = CandidateRanking(limits.candidates, by, separated)
         about = near if by_success and not expected else None
-        # Between grasps that held, and between those on a prior's pairs, lie others that hold nothing.
-        closes = test if built.search is None else believed if about is not None else None
-        if request.collision_free is False and built.search is not None:
-            closes = None
         bounds = bounds_of(request, built, limits, search, test, closes, about, model, threads)
         if robot is not None:
             bounds = replace(bounds, dear=robot.test)
