@@ -25,7 +25,9 @@ def jaw(mass_kg: float) -> Gripper:
 
 def closing(end: End, *forces: float, mass_kg: float = 0.1, touched: bool = True) -> Closing:
     normals = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-    contacts = [Contacts(normals, np.full(2, force), np.array([0, 1])) for force in forces or (10.0,)]
+    contacts = [
+        Contacts(normals, np.full(2, force), np.array([0, 1]), np.zeros(2)) for force in forces or (10.0,)
+    ]
     ratings = tuple(rating(now, jaw(mass_kg), mass_kg, 0.4) for now in contacts)
     pose = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
     return Closing(end, touched, 0.02, tuple(contacts), *pose, steps=9, ratings=ratings)

@@ -207,12 +207,19 @@ class Contacts:
     """What presses on the object at one instant.
 
     ``normals`` (K, 3) are in the tool frame, into the object; ``forces`` (K,) newtons, as exerted with
-    ``Gripper.closing_force_n``; ``fingers`` (K,) which body presses: 0 and 1 the fingers, -1 the palm.
+    ``Gripper.closing_force_n``; ``fingers`` (K,) which body presses: 0 and 1 the fingers, -1 the palm;
+    ``depths`` (K,) how deep it is in the object there, metres.
     """
 
     normals: NDArray[np.float64]
     forces: NDArray[np.float64]
     fingers: NDArray[np.int64]
+    depths: NDArray[np.float64]
+
+    @property
+    def sunk_m(self) -> float:
+        """By how much less the fingers are apart than what is between them, metres."""
+        return float(sum(self.depths[self.fingers == one].max(initial=0.0) for one in (0, 1)))
 
 
 @dataclass(frozen=True)

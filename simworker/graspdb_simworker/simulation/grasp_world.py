@@ -406,6 +406,6 @@ class GraspWorld:
         if not all(map(math.isfinite, (*position, *quaternion))):
             end = End.UNSTABLE
         elif end is End.STALLED:
-            opening -= 2.0 * self._engine.inflated_m
+            opening += contacts[-1].sunk_m - 2.0 * self._engine.inflated_m
         held, rated = (tuple(contacts), tuple(counted(ratings))) if end is End.STALLED else ((), ())
         return Closing(end, touched, opening, held, position, quaternion, steps, ratings=rated)

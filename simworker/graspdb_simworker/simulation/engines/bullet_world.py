@@ -150,6 +150,7 @@ class BulletWorld(EngineWorld):
             np.array([[-c for c in contact[7]] for contact in contacts], dtype=np.float64).reshape(-1, 3),
             np.array([contact[9] for contact in contacts], dtype=np.float64),
             np.array([contact[3] for contact in contacts], dtype=np.int64),
+            np.array([-contact[8] for contact in contacts], dtype=np.float64),
         )
 
     def body(self) -> tuple[Vector, Quaternion]:

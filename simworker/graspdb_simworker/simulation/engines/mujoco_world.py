@@ -105,7 +105,8 @@ class MujocoWorld(EngineWorld):
         jaw, normals, forces = self._touching()
         on = forces > 0.0
         fingers = np.where(jaw == _PALM, -1, jaw - _FIRST_FINGER)
-        return Contacts(normals[on], forces[on], fingers[on].astype(np.int64))
+        depths = -self._data.contact.dist[on]
+        return Contacts(normals[on], forces[on], fingers[on].astype(np.int64), depths)
 
     def _touching(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
         """Of the last step's contacts the geom of the jaw, the normal (n, 3) into the object, the force."""
