@@ -127,11 +127,7 @@ def question_of(
             return objectives.by_success(wide, chance, believed, near.pull, threads)
         return objectives.by_density(search, threads)
 
-    closes = test if built.search is None else None
-    if by_success and model is not None and request.collision_free is not False:
-        # Between grasps that held lie others that hold nothing, as they do between those on a prior's pairs.
-        closes = ctx.evidence.closing(built)
-        closes = None if closes is None else closes.preshaped(request.pre_opening_m)
+    closes = _closing(ctx, request, built, test, by_success and model is not None)
 
     def complete() -> Question:
         by, ranking = ranked()
@@ -148,6 +144,17 @@ def question_of(
         return Question(*found, engine, ranking, calibration, symmetry, request.pre_opening_m, robot)
 
     return ctx.compute.run(complete)
+
+
+def _closing(
+    ctx: Estimators, request: GraspConstraints, built: Built, test: CollisionTest | None, by_success: bool
+) -> CollisionTest | None:
+    """By what a best grasp has to close on something; None where its density sees to that."""
+    if by_success and request.collision_free is not False:
+        # Between grasps that held lie others that hold nothing, as they do between those on a prior's pairs.
+        closes = ctx.evidence.closing(built)
+        return None if closes is None else closes.preshaped(request.pre_opening_m)
+    return test if built.search is None else None
 
 
 def _without_attempts(built: Built) -> None:
