@@ -1,16 +1,16 @@
 """Estimators of success on random grasps of the paper's four objects: what they know of attempts left out.
 
 ``python tests/benchmarks/_success_estimators.py [OBJECT ...] [--attempts 40000] [--learn 300,3000,36000]
-[--splits 2] [--labels FOLDER]``
+[--splits 2] [--labels FOLDER] [--engine pybullet] [--cases random,cubes,plain]``
 
 Grasps are drawn uniformly in position and rotation about an object; those that don't collide and have
 something between the fingers are simulated (`wrench`), which takes a minute and a half for 40,000; labels are
 kept in FOLDER and read from there. Learned from some, judged on 4,000 others drawn at random, or on cubes of
-45 mm that are left out of the learning whole. A line has the numbers of the kernel estimate under the
-density's widths, then of what was learned: Brier skill; expected calibration error above 0.1; the largest
-difference of predicted and true in a tenth beyond two standard errors; of the blocks (15 mm, or the cubes)
-predicted between 0.05 and 0.95, the share whose successes intervals and chance explain; the share of attempts
-that are told at all, and their skill.
+45 mm that are left out of the learning whole; ``plain`` is at random, without the object's shape. A line has
+the numbers of the kernel estimate under the density's widths, then of what was learned: Brier skill; expected
+calibration error above 0.1; the largest difference of predicted and true in a tenth beyond two standard
+errors; of the blocks (15 mm, or the cubes) predicted between 0.05 and 0.95, the share whose successes
+intervals and chance explain; the share of attempts that are told at all, and their skill.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import argparse
 import math
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binom
 
 from graspdb.examples import EXAMPLES
+from graspdb.wire.sweeps import Engine
 from graspdb_density import SuccessEstimate, SuccessModel, choose_widths, validate_reach
 from graspdb_density.kde.rows import Rows
 from graspdb_density.se3 import Poses
@@ -53,14 +54,14 @@ class Labelled(NamedTuple):
     features: GraspFeatures
 
 
-def labelled(name: str, count: int, folder: Path | None) -> Labelled:
+def labelled(name: str, count: int, folder: Path | None, engine: Engine) -> Labelled:
     """Grasps of an object, simulated now or once."""
-    payload, parts = inputs.load(name, "pg70", protocol="wrench")
+    payload, parts = inputs.load(name, "pg70", protocol="wrench", engine=engine)
     corners = np.concatenate([vertices[faces] for vertices, faces in map(_arrays, parts)])
     features = GraspFeatures(
         ClosingGeometry(corners, mass_properties(corners).centre), shape_of(payload.gripper)
     )
-    kept = None if folder is None else folder / f"{name}-{count}.npz"
+    kept = None if folder is None else folder / f"{name}-{engine}-{count}.npz"
     if kept is not None and kept.exists():
         stored = np.load(kept)
         return Labelled(Poses(stored["positions"], stored["quaternions"]), stored["held"], features)
@@ -166,11 +167,14 @@ def main() -> None:
     parser.add_argument("--learn", default="300,3000,36000")
     parser.add_argument("--splits", type=int, default=2)
     parser.add_argument("--labels", type=Path)
+    parser.add_argument("--engine", choices=get_args(Engine), default="pybullet")
+    parser.add_argument("--cases", default="random,cubes,plain")
     asked = parser.parse_args()
     for name in asked.objects:
-        data = labelled(name, asked.attempts, asked.labels)
-        print(f"{name}: {data.held.mean():.3f} of {len(data.held):,} hold")
-        for cubes, shapes in ((False, True), (True, True), (False, False)):
+        data = labelled(name, asked.attempts, asked.labels, asked.engine)
+        print(f"{name}: {data.held.mean():.3f} of {len(data.held):,} hold", flush=True)
+        for case in asked.cases.split(","):
+            cubes, shapes = case == "cubes", case != "plain"
             where = "cubes of 45 mm left out" if cubes else "others at random"
             for learn in map(int, asked.learn.split(",")):
                 for split in range(asked.splits):
