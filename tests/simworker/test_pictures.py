@@ -35,7 +35,10 @@ def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
 def test_show_draws_the_grasp_it_simulates(tmp_path: Path) -> None:
     done = run("show", "mug", "--position", "0,0.028,0.035", "--quaternion", "1,0,0,0", folder=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.splitlines()[-1].startswith("success: fingers 0.005")
+    said = done.stdout.splitlines()[-1]
+    assert said.startswith("success: fingers 0.00")
+    # Flat pads touch the round wall of 4 mm in the middle outside and by their edges inside: 6.2 mm apart.
+    assert float(said.split()[2]) == pytest.approx(0.0062, abs=3e-4)
     with Image.open(tmp_path / "grasp.png") as picture:
         assert picture.format == "PNG"
         image = np.asarray(picture)
