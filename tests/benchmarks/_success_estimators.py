@@ -170,6 +170,8 @@ def main() -> None:
     parser.add_argument("--engine", choices=get_args(Engine), default="pybullet")
     parser.add_argument("--cases", default="random,cubes,plain")
     asked = parser.parse_args()
+    if unknown := set(asked.cases.split(",")) - {"random", "cubes", "plain"}:
+        parser.error(f"--cases are random, cubes and plain, not {', '.join(sorted(unknown))}")
     for name in asked.objects:
         data = labelled(name, asked.attempts, asked.labels, asked.engine)
         print(f"{name}: {data.held.mean():.3f} of {len(data.held):,} hold", flush=True)

@@ -19,8 +19,6 @@ import bench
 
 SHARES = (0.4, 0.8, 1.25, 1.5)
 """Of the angle of friction, by which wedges lean: below 1 they are held."""
-
-
 KINDS = {"boxes": bench.boxes, "cylinders": bench.cylinders, "balls": bench.balls}
 
 
